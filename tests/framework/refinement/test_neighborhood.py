@@ -79,38 +79,27 @@ def test_neighborhood_thread_schedule_balances_costs():
         assert max(loads) <= sum(costs) / threads + max(costs, default=0), "expected a load within Graham's bound"
 
 
-def test_neighborhood_excludes_structure_from_ring_and_border():
-    """Structure is treated like missing depth, except in the cluster itself."""
-    masks, frame = random_scene(0)
-    structure = np.random.default_rng(1).random((40, 60)) < 0.5
-    clusters = clusters_of(masks, frame)
-    found = neighborhoods(replace(clusters, structure=structure), frame, 0.25, 6, 8)
-    in_a_mask = masks.any(axis=0)
-    for k in range(5):
-        own = masks[k] & (frame.depth > 0)
-        seen = (frame.depth > 0) & ~structure
-        outside, inside = _chamfer_reference(own), _chamfer_reference(~own & seen)
-        ring = ~own & seen & (outside <= 3 * found.ring_widths[k])
-        part = slice(found.starts[k], found.starts[k + 1])
-        expected = np.concatenate([inside[own], -outside[ring]]) / 3
-        np.testing.assert_allclose(found.depth_in_mask[part], expected, rtol=1e-6)
-        assert (found.points_camera[part, 2] > 0).all()
-    assert (structure & in_a_mask & (frame.depth > 0)).any(), "expected some structure in a mask"
+@pytest.mark.parametrize("fraction", [0.0, 0.5])
+def test_depth_in_mask_equals_chamfer_distance(fraction: float):
+    """The distance in a cluster is to the nearest outer pixel with depth. In the ring, it is to the cluster.
 
-
-def test_depth_in_mask_equals_chamfer_distance():
-    """The distance in a cluster is to the nearest outer pixel with depth. In the ring, it is to the cluster."""
+    Structure is treated like missing depth, except in the cluster itself.
+    """
     for seed in range(5):
         masks, frame = random_scene(seed)
-        around = neighborhoods(clusters_of(masks, frame), frame, ring_fraction=0.25, min_ring=6, max_ring=8)
+        structure = np.random.default_rng(1).random((40, 60)) < fraction
+        clusters = replace(clusters_of(masks, frame), structure=structure)
+        around = neighborhoods(clusters, frame, ring_fraction=0.25, min_ring=6, max_ring=8)
         for k in range(5):
-            own, seen = masks[k] & (frame.depth > 0), frame.depth > 0
+            own, seen = masks[k] & (frame.depth > 0), (frame.depth > 0) & ~structure
             outside, inside = _chamfer_reference(own), _chamfer_reference(~own & seen)
             ring = ~own & seen & (outside <= 3 * around.ring_widths[k])
             expected = np.concatenate([inside[own], -outside[ring]]) / 3
-            found = around.depth_in_mask[around.starts[k] : around.starts[k + 1]]
-            np.testing.assert_allclose(found, expected, rtol=1e-6)
-            assert around.mask_radii[k] == found.max(initial=0)
+            part = slice(around.starts[k], around.starts[k + 1])
+            np.testing.assert_allclose(around.depth_in_mask[part], expected, rtol=1e-6)
+            assert around.mask_radii[k] == around.depth_in_mask[part].max(initial=0)
+            assert (around.points_camera[part, 2] > 0).all()
+        assert (structure & masks.any(axis=0) & (frame.depth > 0)).any() == (fraction > 0)
 
 
 def test_neighborhood_without_ring_has_only_mask_points():

@@ -112,11 +112,10 @@ def test_absolute_pose_rejects_matches_with_inconsistent_depth() -> None:
 
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 0.0), (0.01, 0.02, 0.01)], ids=["point", "line"])
-def test_absolute_pose_of_degenerate_points_does_not_raise(direction: tuple[float, float, float]) -> None:
+def test_absolute_pose_of_degenerate_points_is_unknown(direction: tuple[float, float, float]) -> None:
     points = np.array([0.1, 0.2, 2.0]) + np.outer(np.arange(50), direction)
     pixels = project(CAMERA, points)
-    found = AbsolutePoseEstimator().estimate(CAMERA, pixels, points)
-    assert found is None or np.isfinite(found.T_world_camera).all()
+    assert AbsolutePoseEstimator().estimate(CAMERA, pixels, points) is None
 
 
 @pytest.mark.parametrize("bound", [{"max_error": 0.0}, {"min_inliers": 3}, {"min_inlier_ratio": 1.5}, {"seed": -1}])

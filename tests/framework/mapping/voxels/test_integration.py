@@ -113,12 +113,6 @@ def test_integration_allocates_blocks_near_surface() -> None:
     )
 
 
-def test_integration_rounding_averages_are_unbiased() -> None:
-    """The stored values are integers, but the average of a constant must be exact."""
-    rounding = [(k * GOLDEN) % 1.0 for k in range(1, 1001)]
-    assert abs(np.mean(np.floor(0.3 + np.array(rounding))) - 0.3) < 0.01
-
-
 @pytest.mark.parametrize("frame_number", [987, 2584, 121393])
 def test_integration_rounding_does_not_wrap_around(frame_number: int) -> None:
     """In these frames, the rounding offset is almost 1 and must not cause an overflow."""
@@ -284,17 +278,15 @@ def test_integration_removes_object_from_observed_free_space() -> None:
     before = int(
         ((grid.tsdf[: integrator.voxels.block_count] < 0) & (grid.weight[: integrator.voxels.block_count] > 0)).sum()
     )
+    assert before > 0
     for _ in range(10):
         integrator.integrate(empty.frame(pose()), np.eye(4), VOXEL)
-    bare = new_integrator()
-    bare.integrate(empty.frame(pose()), np.eye(4), VOXEL)
     center = np.array([-0.5, 0.6, 1.62])  # m, on the front of the first sphere
     block = {tuple(c): b for b, c in enumerate(grid.block_coords[: integrator.voxels.block_count])}
     voxel = np.round(center / VOXEL).astype(int)
     b = block[tuple(voxel >> 3)]
     x, y, z = voxel & 7
     assert integrator.voxels.grid.tsdf[b, (z * 8 + y) * 8 + x] > 0
-    assert before > 0
 
 
 def test_integration_is_independent_of_thread_count() -> None:

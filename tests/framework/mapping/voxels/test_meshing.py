@@ -2,7 +2,6 @@
 
 import itertools
 
-import numba
 import numpy as np
 import open3d as o3d
 import pytest
@@ -21,6 +20,7 @@ from plugins.detectors.none import NoDetections
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.support.rendered_frames import rendered_frames
 from tests.support.scenes.analytic_scene import room, walk
+from tests.support.thread_counts import by_one_thread_and_two
 
 pytestmark = pytest.mark.integration
 
@@ -159,17 +159,9 @@ def test_surface_nets_reread_only_changed_blocks(sphere: VoxelGrid) -> None:
     )
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_surface_nets_are_independent_of_thread_count(sphere: VoxelGrid, threads: int) -> None:
-    if threads > numba.config.NUMBA_NUM_THREADS:
-        pytest.skip(f"this machine runs at most {numba.config.NUMBA_NUM_THREADS} threads")
-    expected = SurfaceNets(sphere).extract()
-    usual = numba.get_num_threads()
-    numba.set_num_threads(threads)
-    try:
-        assert all(map(np.array_equal, SurfaceNets(sphere).extract(), expected))
-    finally:
-        numba.set_num_threads(usual)
+def test_surface_nets_are_independent_of_thread_count(sphere: VoxelGrid) -> None:
+    for one, two in zip(*by_one_thread_and_two(lambda: SurfaceNets(sphere).extract()), strict=True):
+        np.testing.assert_array_equal(one, two)
 
 
 def detections(frame: Frame) -> Detections:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from framework.data import Camera, Frame
-from framework.geometry import back_project
 from framework.refinement.segmentation.planes import Planes, find_planes, plane_image
 from framework.refinement.segmentation.planes_kernels import _order
 from tests.support.thread_counts import by_one_thread_and_two
@@ -160,11 +159,3 @@ def test_find_planes_is_independent_of_thread_count():
 
     for one, other in zip(*by_one_thread_and_two(find), strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-def test_inverse_depth_of_plane_is_linear_in_pixel():
-    """Plane detection depends on this property."""
-    depth = depth_of(WALL).astype(np.float32)
-    v, u = np.mgrid[:240, :320]
-    points = back_project(CAMERA, np.stack([u.ravel(), v.ravel()], axis=1).astype(np.int32), depth.ravel())
-    np.testing.assert_allclose(points @ WALL, 1, atol=1e-5)
