@@ -15,6 +15,7 @@ from tests.endurance.growth import BOUNDS, Measured, Verdict
 PLACES = ("redkitchen", "freiburg1_rpy", "standing", "room")
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("shared_data")
 def test_short_run_writes_page_and_figure(tmp_path: Path) -> None:
     found = lane.run(lane.MIN_FRAMES, tmp_path)
