@@ -43,7 +43,11 @@ class ParameterError(ConfigError):
 
     def __init__(self, owner: str, name: str, problem: str) -> None:
         super().__init__(f"{owner}.{name}: {problem}")
-        self.name, self.problem = name, problem
+        self.owner, self.name, self.problem = owner, name, problem
+
+    def __reduce__(self) -> tuple[type[ParameterError], tuple[str, str, str]]:
+        """Return the arguments of the constructor, because processes exchange errors."""
+        return type(self), (self.owner, self.name, self.problem)
 
 
 class DataError(InstanceMapError):

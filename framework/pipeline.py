@@ -418,14 +418,18 @@ class Pipeline:
     def apply(self, change: SubmapChange, journal: Journal) -> None:
         """Change the map, and move the poses of earlier frames with it."""
         merged: Mapping[int, int] = {}
+        full: MapFullError | None = None
         try:
             merged = self.fuser.correct(change)
-        finally:  # the submaps of a full map have moved, too
-            self.tracker.correct(change)
-            self.color_to_depth.correct(change, journal.tracked.submap)
-            if self.T_world_color is not None:
-                self.T_world_color = change.moved(journal.tracked.submap, self.T_world_color)
-            journal.corrected(change, merged)
+        except MapFullError as error:  # the submaps have moved
+            full = error
+        self.tracker.correct(change)
+        self.color_to_depth.correct(change, journal.tracked.submap)
+        if self.T_world_color is not None:
+            self.T_world_color = change.moved(journal.tracked.submap, self.T_world_color)
+        journal.corrected(change, merged)
+        if full is not None:
+            raise full
         self.viewer.correct(change, self.backend.graph())
 
     def compare_with_map(self, frame: Frame, pose: Pose, journal: Journal) -> None:

@@ -9,8 +9,9 @@ import dataclasses
 import importlib.util
 import inspect
 import pkgutil
+import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from importlib.machinery import ModuleSpec
@@ -97,7 +98,7 @@ def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
         if isinstance(value, Path):
             usable_path(f"{stage}.{name}", value)
     try:
-        with _errors_at(where, stage, stage):
+        with _errors_at(where, stage, stage, arguments):
             plugin: Plugin = assemble(plugin_class, **arguments)
     except (ImportError, ValueError) as error:
         raise ConfigError(f"{where}: expected a working constructor, got an error ({first_line(error)})") from error
@@ -127,24 +128,25 @@ def text_kind(config: DictConfig, key: str) -> TextKind | None:
 
 
 @contextmanager
-def _errors_at(where: str, stage: str, key: str) -> Iterator[None]:
-    """Prepend `where` to the message of an InstanceMapError in the `with` body.
+def _errors_at(where: str, stage: str, key: str, names: Iterable[str]) -> Iterator[None]:
+    """Prepend `where` to the message of an InstanceMapError in the `with` body, unless it begins with a parameter.
 
-    If the message begins with a parameter, such as "refiner.eps: ...", it begins with `key` instead of the stage.
+    In messages of a nested plugin, parameters such as "refiner.eps" become "refiner.links.dbscan.eps".
 
     Args:
         where: Stage and class name, and the parameter of a nested plugin.
         stage: Stage of the plugin.
         key: Config key of the plugin: the stage, or for example refiner.links.dbscan.
+        names: Parameters of the plugin.
     """
+    parameter = re.compile(rf"(?<![\w./-]){stage}\.(?=({'|'.join(names) or '$'})\b)")
     try:
         yield
     except ParameterError as error:
         raise ConfigError(f"{key}.{error.name}: {error.problem}") from error
     except InstanceMapError as error:
-        message = str(error)
-        named = message.startswith(f"{stage}.")
-        raise type(error)(f"{key}{message.removeprefix(stage)}" if named else f"{where}: {message}") from error
+        message = parameter.sub(f"{key}.", str(error))
+        raise type(error)(message if parameter.match(str(error)) else f"{where}: {message}") from error
 
 
 def assemble(plugin_class: type[Plugin], /, **values: Any) -> Plugin:
@@ -303,7 +305,7 @@ def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
             f"{where}: expected all methods of {interface.__name__} in {class_name}, got none for: {missing}; "
             "implement them"
         )
-    with _errors_at(where, where.split()[0], where.split()[0]):
+    with _errors_at(where, where.split()[0], where.split()[0], ()):
         parameter_fields(found)
     plugin_class: type[Plugin] = found
     return plugin_class
@@ -416,14 +418,14 @@ def _inner(where: str, key: str, interface: type[Any], node: Any, one: bool) -> 
     """Return a nested plugin or a mapping of nested plugins by name, without null entries."""
     outer, stage = where.split()[0], stage_of(interface)
     if one:
-        with _errors_at(f"{where}: {key}", stage, f"{outer}.{key}"):
+        with _errors_at(f"{where}: {key}", stage, f"{outer}.{key}", map(str, node or ())):
             return build(interface, node)
     if not isinstance(node, DictConfig):
         raise ConfigError(f"{where}: {key}: expected plugins by name, got {_shown(node)}")
     found = {}
     for name in map(str, node):
         if node[name] is not None:
-            with _errors_at(f"{where}: {key}.{name}", stage, f"{outer}.{key}.{name}"):
+            with _errors_at(f"{where}: {key}.{name}", stage, f"{outer}.{key}.{name}", map(str, node[name])):
                 found[name] = build(interface, node[name])
     return found
 

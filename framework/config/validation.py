@@ -44,7 +44,7 @@ def check_bounds(plugin: object, **bounds: tuple[float, float]) -> None:
         bounds: The interval (low, high) of each parameter by name.
 
     Raises:
-        ParameterError: A parameter is outside of its interval. The registry replaces the class by the stage.
+        ConfigError: A parameter is outside of its interval.
     """
     for name, (low, high) in bounds.items():
         value = getattr(plugin, name)

@@ -85,5 +85,6 @@ def environment() -> Iterator[Check]:
     for name in sorted(name for name in os.environ if name.startswith(PREFIXES)):
         _, _, error = errors.get(name, "").partition(": ")
         detail, _, fix = error.partition("; ")
-        value = "set" if SECRET.search(name) else anonymous(os.environ[name]) or '""'
+        given = anonymous(os.environ[name]) or '""'
+        value = "set" if SECRET.search(name) and os.environ[name] else given
         yield Check.of(name, not error, detail or value, fix, required=True)

@@ -180,13 +180,13 @@ class InstanceMap(InstanceTableMap):
             MapFullError: If the volume needs too many blocks.
         """
         merged: dict[int, int] = {}
-        self.submaps.move(change.motions)
         try:
+            self.submaps.move(change.motions)
             for number in sorted(change.shown):
                 self._merge_pairs(self.submaps.show(number, association.min_overlap, association.create_points), merged)
             self.submaps.hide(change.hidden)
-            self.submaps.current = change.submap
         finally:
+            self.submaps.current = change.submap
             self.relabel()
         return {k: remaining(k, merged) for k in merged}
 

@@ -28,7 +28,7 @@ class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
     def line_is_due(self) -> bool:
         """Return True if no bar is shown and it is time for a log line.
 
-        The interval is 10 % of the elapsed time, limited to [MIN_INTERVAL, MAX_INTERVAL].
+        The interval is 10% of the elapsed time, limited to [MIN_INTERVAL, MAX_INTERVAL].
         """
         now = time.monotonic()
         interval = min(max(MIN_INTERVAL, 0.1 * (now - self._begun)), MAX_INTERVAL)

@@ -79,7 +79,7 @@ def normals_of(frame: Frame) -> Float32:
     Returns:
         The normals (H, W, 3) in the camera frame, a read-only view that is not contiguous: unit vectors toward the
         camera, and 0 where unknown. A normal is unknown at the image border, without depth at the pixel or at one of
-        its neighbors, and at jumps of more than 5 % of the depth.
+        its neighbors, and at jumps of more than 5% of the depth.
     """
     with _normals_lock:
         if NORMALS not in frame.depth_cache:

@@ -99,19 +99,21 @@ class VoxelHashingIcp(PoseTracker):
     residual_weights: ResidualWeights = ResidualWeights.TUKEY  # weights of residuals
     finest_scale: float = 0.5  # scale of the finest level and of the map's view relative to the image, a power of 1/2
     finest_side: int = 640  # maximum side of the finest level, px, >= 0; larger levels are halved; 0 = unlimited
-    iterations_coarse: int = 8  # number of iterations at 1/4 of the finest resolution, >= 0
-    iterations_middle: int = 6  # number of iterations at 1/2 of the finest resolution, >= 0
-    iterations_fine: int = 4  # number of iterations at the finest resolution, >= 1
+    iterations_coarse: int = 8  # number of iterations at 1/4 of the finest resolution, in [0, 1000]
+    iterations_middle: int = 6  # number of iterations at 1/2 of the finest resolution, in [0, 1000]
+    iterations_fine: int = 4  # number of iterations at the finest resolution, in [1, 1000]
     # maximum distance of corresponding points, m, in [0.0001, 10]; increases with depth beyond 5 m (TUKEY)
     max_distance: float = 0.1
     # maximum distance of a point from the map's surface to agree with the map, m, in [0.0001, 10]; at least 3 sigma of
     # depth noise
     close_distance: float = 0.05
     min_normal_dot: float = 0.7  # minimum cosine between corresponding normals, in [-1, 1]
-    geometric_scale: float = 4.0  # cut-off of point-to-plane distances, in standard deviations, > 0 (TUKEY)
-    photometric_scale: float = 4.0  # cut-off of intensity differences, in standard deviations, > 0 (TUKEY)
-    intensity_noise: float = 0.05  # standard deviation of intensity differences, for intensities in [0, 1], > 0 (TUKEY)
-    # intensity difference at which the weight reaches 0, for intensities in [0, 1], > 0 (LINEAR)
+    # cut-off of point-to-plane distances, in standard deviations, in [0.001, 1000] (TUKEY)
+    geometric_scale: float = 4.0
+    photometric_scale: float = 4.0  # cut-off of intensity differences, in standard deviations, in [0.001, 1000] (TUKEY)
+    # standard deviation of intensity differences, for intensities in [0, 1], in [0.001, 1] (TUKEY)
+    intensity_noise: float = 0.05
+    # intensity difference at which the weight reaches 0, for intensities in [0, 1], in [0.001, 1] (LINEAR)
     max_intensity_difference: float = 0.1
     color_weight: float = 0.1  # weight lambda of the photometric term, >= 0; 0 = ICP only
     color_levels: int = 3  # number of levels with color, from the coarsest, in [1, 3]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 PAGE = CHECKOUT / "docs" / "results" / "acceptance.md"
-COLUMNS = ("measurement", "value", "bound", "commit, date", "processor")
+COLUMNS = ("measurement", "value", "bound", "commit, date", "machine")
 HEADER = """# Acceptance
 
 Check accuracy, robustness and speed against their bounds:
@@ -23,7 +23,7 @@ make acceptance
 
 The command runs missing and outdated measurements. A measurement is outdated if its code has changed. All measurements
 take about five hours. `make acceptance MEASUREMENT=NAME` runs one of them. Real sequences are read from
-`../shared/data`. All values are from machines with 2 cores.
+`../shared/data`.
 
 - `building_*`: worst of three buildings with five rooms each, unless stated otherwise
 - *oracle*: map from the corrected poses and depth
@@ -91,7 +91,7 @@ def measure(chosen: Measurement) -> list[str]:
     commit = commit_of(chosen.paths)
     value, met = chosen.measure()
     shown = f"{value:.4g}" if met else f"{value:.4g} (missed)"
-    return [chosen.name, shown, chosen.bound, f"{commit}, {date.today()}", processor()]
+    return [chosen.name, shown, chosen.bound, f"{commit}, {date.today()}", machine()]
 
 
 def run(names: Sequence[str]) -> bool:
@@ -121,10 +121,5 @@ def _git(*arguments: str, missing: str = "") -> str:
 
 def machine() -> str:
     """Return the number of cores and the name of the processor."""
-    return f"{os.cpu_count()} cores, {processor()}"
-
-
-def processor() -> str:
-    """Return the name of the processor."""
     cpu = next((text for text in Path("/proc/cpuinfo").read_text().splitlines() if text.startswith("model name")), "")
-    return cpu.partition(":")[2].strip() or "unknown processor"
+    return f"{os.cpu_count()} cores, {cpu.partition(':')[2].strip() or 'unknown processor'}"

@@ -7,7 +7,7 @@ import pickle
 import pytest
 
 from framework.config.composition import one_line
-from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, printable, reason_of
+from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, ParameterError, printable, reason_of
 
 
 def test_error_message_of_usual_text_is_unchanged() -> None:
@@ -46,3 +46,8 @@ def test_reason_of_quoted_file_is_short_line() -> None:
 def test_frame_error_pickle_round_trip_keeps_message() -> None:
     error = pickle.loads(pickle.dumps(FrameError("frame 3 is damaged")))
     assert (type(error), str(error)) == (FrameError, "frame 3 is damaged")
+
+
+def test_parameter_error_survives_other_process() -> None:
+    error = pickle.loads(pickle.dumps(ParameterError("Dbscan", "eps", "expected at least 0.001, got 0")))
+    assert (str(error), error.name) == ("Dbscan.eps: expected at least 0.001, got 0", "eps")

@@ -75,8 +75,8 @@ def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> N
     view = scene.render(source.camera or NOT_CAMERA, T_world_camera)
     if not (view.depth > 0).any():
         raise DataError(
-            f"--frame: expected a pose with the map in view, got an empty view from {place}; set another --frame or "
-            "--pose"
+            f"{'--frame' if pose is None else '--pose'}: expected a pose with the map in view, got an empty view from "
+            f"{place}; set another --frame or --pose"
         )
     centers = {key: one.aabb.center for key, one in objects.items()}
     note = f"{contents.name}, {place}, ray-cast from the final map. Commit {contents.record.commit}."

@@ -59,7 +59,7 @@ def main() -> None:
             folder = stack.enter_context(opened_bundle(folder, parsed.trust_code))
         if out is None and not parsed.check_only:
             out = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="instancemap_")))
-        different = reproduce_all(folder, parsed.overrides, parsed.cell, None if parsed.check_only else out)
+        different = reproduce_all(folder, parsed.overrides, parsed.row, None if parsed.check_only else out)
     if different:
         sys.exit(EXIT_FAILED)
 

@@ -20,7 +20,6 @@ import numpy as np
 
 from framework.data import Camera, Float64
 from framework.datasets.calibration.undistortion import Distortion
-from framework.datasets.frames.conventions import check_depth_scale
 from framework.errors import DataError, errors_of
 from framework.files.number_lines import COMMENT, SHOWN, number, read_lines
 
@@ -97,8 +96,6 @@ def _named(path: Path, text: str) -> TextCalibration:
     if _OTHER_LENS.search(text) or values.get("k4"):
         raise _unknown(path, "another lens model")
     scale = next((values[key] for key in SCALES if key in values), None)
-    if scale is not None:
-        check_depth_scale(f"{path}: depth scale", scale)
     matrix, lens = _MATRIX.search(text), _LENS.search(text)
     if all(key in values for key in KEYS):
         intrinsics = tuple(values[key] for key in KEYS)

@@ -20,7 +20,6 @@ import numpy as np
 from framework.datasets.calibration.calibration_text import intrinsics_of, read_calibration
 from framework.datasets.calibration.camera_json import StoredCamera, pinhole, read_camera
 from framework.datasets.calibration.color_registration import ColorRegistration, registered_images
-from framework.datasets.frames.conventions import check_depth_scale
 from framework.datasets.frames.numbered_images import first_size
 from framework.datasets.frames.sequence_reader import StoredImages
 from framework.errors import DataError, errors_of
@@ -107,6 +106,4 @@ def _sensor_info(path: Path) -> OwnCamera:
     color, depth = cameras
     with errors_of(path):
         registration = None if color == depth else ColorRegistration(color, depth)
-    depth_scale = values("m_depthShift", 1)[0]
-    check_depth_scale(f"{path}: m_depthShift", depth_scale)
-    return OwnCamera(StoredCamera(depth, depth_scale, None), path, registration)
+    return OwnCamera(StoredCamera(depth, values("m_depthShift", 1)[0], None), path, registration)

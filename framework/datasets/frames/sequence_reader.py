@@ -33,6 +33,7 @@ from framework.datasets.frames.conventions import (
     LONGEST_COLOR_DELAY,
     DepthReading,
     PoseReading,
+    check_depth_scale,
     color_delay_of,
 )
 from framework.datasets.frames.odometry import KEY as ODOMETRY_KEY
@@ -175,6 +176,7 @@ class Recording(RGBDSequence):
         stored = self.open()
         timed = [_in_seconds(frame, self.time_unit) for frame in stored.frames]
         depth_scale = self.depth_reading.depth_scale or stored.depth_scale
+        check_depth_scale(f"{stored.camera_source}: depth scale", depth_scale)
         posed = self._posed_frames(delay_poses(timed, self.pose_reading.pose_delay))
         ordered = _in_order_of_time(self.name, _with_plausible_image_times(self.name, posed))
         frames = delay_depth(ordered, self.depth_reading.depth_delay)
@@ -190,9 +192,7 @@ class Recording(RGBDSequence):
         if self.odometry is not None:
             self._check_odometry(self.odometry)
         if self.ground_truth is not None and any(self.world_origin):
-            poses = [frame.T_world_camera for frame in frames if frame.T_world_camera is not None]
-            cameras = np.array([T[:3, 3] for T in poses]).reshape(-1, 3)
-            self.named_truth = read_named_truth(Path(self.ground_truth), self.world_origin, cameras)
+            self.named_truth = read_named_truth(Path(self.ground_truth), self.world_origin)
         if self.named_truth is not None:
             self.annotation = self.named_truth.name
             self._check_truth_poses(self.named_truth)

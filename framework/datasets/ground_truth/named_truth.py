@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from framework.data import Float64, Int32, ReferenceTrajectory
+from framework.datasets.frames.world_offset import origin_comments
 from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import path_exists
@@ -29,6 +30,7 @@ from framework.files.manifest import verified
 from framework.files.ply import PlyMesh, found_property, read_ply
 from framework.files.search_paths import candidates
 from framework.files.tum_trajectory import read_tum
+from framework.geometry import FARTHEST
 from framework.vocabulary.label_spaces import COCO, LONGEST_CLASS_NAME, MEANINGS, with_similar
 
 KEY = "dataset.ground_truth"
@@ -61,15 +63,13 @@ class NamedTruth:
         return self.trajectory.T_world_camera[k] if k >= 0 else None
 
 
-def read_named_truth(path: Path, origin: Sequence[float] = (), cameras: Float64 | None = None) -> NamedTruth:
+def read_named_truth(path: Path, origin: Sequence[float] = ()) -> NamedTruth:
     """Read the ground truth in a run directory or a labeled mesh.
 
     Args:
         path: The run directory or the mesh.
         origin: Origin of the mapped world frame in the world frame of the recording (3,), m; () = 0. It is subtracted
             from a mesh in the world frame of the recording.
-        cameras: Positions (P, 3) of the cameras in the mapped world frame, m. The mesh is in the world frame in which
-            it is closer to the cameras. None = at the origin.
 
     Raises:
         ConfigError: The path does not exist.
@@ -85,7 +85,7 @@ def read_named_truth(path: Path, origin: Sequence[float] = (), cameras: Float64 
         class_names = _classes_of_run(names, content)
         ids = np.where(np.isin(ids, list(class_names)), ids, 0).astype(np.int32)  # tentative instances have no entry
         return NamedTruth(_labeled(mesh, ply, ids, class_names), label, _trajectory_of_run(mesh.parent))
-    if origin and _is_moved(ply, np.array(origin), cameras):
+    if origin and not _is_in_map_world(ply, origin):
         ply = read_ply(mesh, origin)
     class_names = read_class_names(names, LARGEST_ID)
     unlisted = set(np.unique(ids).tolist()) - class_names.keys() - {0}
@@ -96,11 +96,12 @@ def read_named_truth(path: Path, origin: Sequence[float] = (), cameras: Float64 
     return NamedTruth(_labeled(mesh, ply, ids, class_names), label, None)
 
 
-def _is_moved(ply: PlyMesh, origin: Float64, cameras: Float64 | None) -> bool:
-    """Return True if a mesh is closer to the cameras (P, 3) after the origin (3,) is subtracted."""
-    middle = np.zeros(3) if cameras is None or not len(cameras) else np.median(cameras, axis=0)
-    offset = np.median(ply.vertices.astype(np.float64), axis=0) - middle
-    return bool(np.linalg.norm(offset - origin) < np.linalg.norm(offset))
+def _is_in_map_world(ply: PlyMesh, origin: Sequence[float]) -> bool:
+    """Return True if the origin (3,) is already subtracted from a mesh: by its comments, or by its distance."""
+    if set(origin_comments(origin)) & set(ply.comments):
+        return True
+    distance = np.linalg.norm(np.median(ply.vertices, axis=0))
+    return bool(distance <= FARTHEST < np.linalg.norm(origin))
 
 
 def truth_files(path: Path) -> list[Path]:

@@ -89,7 +89,7 @@ def _annotated(path: Path, dataset: Mapping[str, Any]) -> list[Any]:
     for kind, entries in (("image", images), ("category", categories)):
         for k, one in enumerate(entries):
             if not isinstance(one.get("id"), Hashable):
-                raise DataError(f"{path}, {kind} {k}: expected a number or a text as id, got {one['id']!r}")
+                raise DataError(f"{path}, {kind} {k}: expected a numeric or string id, got {one['id']!r}")
     files = {image.get("id"): _file_of(image) for image in images}
     names = {category.get("id"): category.get("name") for category in categories}
     found = []

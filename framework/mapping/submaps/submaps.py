@@ -68,7 +68,11 @@ class Submaps:
             self.hidden[number] = hidden._replace(voxels=voxels)
 
     def move(self, motions: Mapping[int, Float64]) -> None:
-        """Move submaps by T_new_old (4, 4), by number."""
+        """Move submaps by T_new_old (4, 4), by number.
+
+        Raises:
+            MapFullError: If the volume needs too many blocks. A part of the moved submaps is then lost.
+        """
         for number in sorted(motions.keys() & self.hidden.keys()):
             self.hidden[number] = self.hidden[number].moved(motions[number])
         moved = {number: self._blocks_of(number) for number in sorted(motions)}

@@ -318,7 +318,7 @@ def test_precomputed_invalid_entry_raises_one_line_error(tmp_path: Path, changes
         ('{"images": [], "annotations": [{"image_id": []}], "categories": []}', "annotation 0: expected ids of images"),
         (
             '{"images": [{"id": [1]}], "annotations": [], "categories": []}',
-            "image 0: expected a number or a text",
+            "image 0: expected a numeric or string id",
         ),
         ("[]", "expected at least one detection"),
         ("[3]", "entry 0"),

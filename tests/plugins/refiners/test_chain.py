@@ -91,6 +91,10 @@ def test_chain_overrides_set_remove_replace_and_add_links(overrides: list[str], 
     [
         (["refiner.links.gmm_em.std_flor=1"], "Could not override|std_flor"),
         (["refiner.links.gmm_em.std_floor=-1"], r"^refiner\.links\.gmm_em\.std_floor: expected a value in"),
+        (
+            ["refiner@refiner.links.gmm_em=gmm_frame", "refiner.links.gmm_em.children=3"],
+            r"^refiner\.links\.gmm_em\.children: expected .*; set refiner\.links\.gmm_em\.children=8$",
+        ),
         (["refiner.links=3"], "expected plugins by name, got 3|Could not|merge"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from framework.config import composition
 from framework.errors import DataError
 from framework.explanation.contributions import STAGES, Stage
 from framework.explanation.stored_explanation import StoredExplanation
-from framework.runs.stored_runs import read_record
+from framework.runs.stored_runs import GROUND_TRUTH, read_record
 from tests.support.reported_run import FAKES, store_parameter, unverified_copy, write_run
 
 pytestmark = pytest.mark.integration
@@ -51,6 +52,11 @@ def test_explain_stored_config_cannot_read_environment(tmp_path: Path) -> None:
     run = unverified_copy(write_run(tmp_path / "run"), tmp_path / "changed")
     store_parameter(run, "fuser.voxel_size", "${oc.env:SECRET}")
     with pytest.raises(DataError, match=r"fuser\.voxel_size: expected a resolved value in the run's config\.yaml"):
+        explain.explain_run(read_record(run), with_contributions=False)
+    store_parameter(run, "fuser.voxel_size", 0.03)
+    metrics = json.loads((run / "metrics.json").read_text())
+    (run / "metrics.json").write_text(json.dumps(metrics | {GROUND_TRUTH: "${oc.env:SECRET}"}))
+    with pytest.raises(DataError, match=r"dataset\.ground_truth: expected a resolved value"):
         explain.explain_run(read_record(run), with_contributions=False)
 
 

@@ -115,7 +115,7 @@ FAR = ("--pose", 0, 0, -50, 0, 1, 0, 0)
         (["--pose", "nan", 0, 0, 0, 0, 0, 1], "--pose: expected a finite pose, got nan 0 0 0 0 0 1"),
         (
             FAR,
-            "--frame: expected a pose with the map in view, got an empty view from pose 0 0 -50 0 1 0 0; set another "
+            "--pose: expected a pose with the map in view, got an empty view from pose 0 0 -50 0 1 0 0; set another "
             "--frame or --pose",
         ),
         (["--out", "view.jpg"], "--out: expected a name with the suffix .png, got view.jpg"),

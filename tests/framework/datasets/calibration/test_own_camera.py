@@ -16,6 +16,7 @@ import pytest
 from framework.data import Camera
 from framework.datasets.calibration.own_camera import own_camera
 from framework.datasets.calibration.undistortion import Distortion
+from framework.datasets.frames.conventions import DepthReading
 from framework.datasets.icl_nuim import IclNuim
 from framework.datasets.replica_nice_slam import ReplicaNiceSlam
 from framework.datasets.scenenn.scenenn import SceneNN
@@ -183,17 +184,20 @@ def test_own_camera_of_other_program_matches_file(
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "message"),
+    ("file", "content"),
     [
-        ("calibration.yaml", ORB_SLAM.replace("2000.0", "0.001"), "depth scale: expected 1 to 1e+06 units per m"),
-        ("info.txt", INFO.format(color=CAMERA).replace("Shift = 1000", "Shift = 0"), "m_depthShift: expected 1 to 1e"),
+        ("calibration.yaml", ORB_SLAM.replace("2000.0", "0.001")),
+        ("info.txt", INFO.format(color=CAMERA).replace("Shift = 1000", "Shift = 0")),
     ],
 )
-def test_own_camera_implausible_depth_scale_raises(tmp_path: Path, file: str, content: str, message: str) -> None:
-    write_color(tmp_path / "color/0.png", (1, 2, 3), (240, 320))
-    written(tmp_path, file, content)
+def test_own_camera_implausible_depth_scale_raises(tmp_path: Path, file: str, content: str) -> None:
+    folder = tum(tmp_path, (240, 320))
+    path = written(folder, file, content)
+    message = f"{path}: depth scale: expected 1 to 1e+06 units per m (1000 for millimeters), got 0"
     with pytest.raises(DataError, match=re.escape(message)):
-        own_camera("room", tmp_path, [tmp_path / "color/0.png"], 500)
+        TumRgbd(folder.parent, scene=folder.name)
+    corrected = TumRgbd(folder.parent, scene=folder.name, depth_reading=DepthReading(depth_scale=1000))
+    assert corrected.calibration.depth_scale == 1000
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -10,7 +10,7 @@ import pytest
 
 from framework.data import Float64
 from framework.datasets.frames.conventions import PoseKind, PoseReading
-from framework.datasets.frames.world_offset import as_setting, world_offset_of
+from framework.datasets.frames.world_offset import as_setting, origin_comments, world_offset_of
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.datasets.tum_rgbd import TumRgbd
 from framework.errors import ConfigError, DataError, FrameError
@@ -94,14 +94,19 @@ def test_pose_far_from_world_offset_is_refused(tmp_path: Path) -> None:
     ids=str,
 )
 def test_truth_mesh_moves_with_world_offset(tmp_path: Path, shift: tuple[float, ...], world_offset: str) -> None:
-    """A mesh in the world frame of the recording or in that of the map is the same ground truth."""
+    """A mesh in the world frame of the recording or in that of the map is the same ground truth.
+
+    A mesh in the world frame of a map names the origin, or the origin is far.
+    """
     place = recording(tmp_path, shift)
     origin = np.array(RgbdFolder(place, world_offset=world_offset).world_origin)
+    comments = "".join(f"comment {comment}\n" for comment in origin_comments(origin) if world_offset != "AUTO")
     corners = np.array([[0, 0, 1], [1.25, 0, 1], [0, 1.5, 1.125]]) + shift
     (tmp_path / "instances.json").write_text('{"1": {"name": "desk", "class": "dining table"}}')
     for name, vertices in {"world": corners, "map": corners - origin}.items():
         rows = "".join(f"{x:.4f} {y:.4f} {z:.4f} 1\n" for x, y, z in vertices)
-        (tmp_path / f"{name}.ply").write_text(f"{TRIANGLE}{rows}3 0 1 2\n")
+        header = TRIANGLE.replace("element vertex", f"{comments * (name == 'map')}element vertex")
+        (tmp_path / f"{name}.ply").write_text(f"{header}{rows}3 0 1 2\n")
         truth = RgbdFolder(place, ground_truth=tmp_path / f"{name}.ply", world_offset=world_offset).scene_truth()
         assert truth is not None
         np.testing.assert_allclose(truth.points_world, corners - origin, atol=1e-3)
