@@ -316,8 +316,7 @@ def reliability_figure(forecasts: Mapping[str, Forecasts], background: str = "no
         axes.spines[["top", "right"]].set_visible(False)
         axes.spines[["left", "bottom"]].set_color(COLORS["line"])
         axes.tick_params(length=0, labelsize=TEXT_PX, labelcolor=COLORS["faint"])
-        label = "x: mean predicted probability, y: observed fraction"
-        axes.set_xlabel(label, loc="right", fontsize=TEXT_PX, color=COLORS["faint"])
+        axes.set_xlabel("x: predicted, y: observed fraction", loc="right", fontsize=TEXT_PX, color=COLORS["faint"])
         heading = f"{title}: n = {len(one)}, ECE {one.ece():.2f}"
         axes.set_title(heading, loc="left", fontsize=TEXT_PX, color=COLORS["faint"])
     return figure
