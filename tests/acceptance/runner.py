@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import time
 from collections.abc import Callable, Sequence
@@ -122,4 +123,5 @@ def _git(*arguments: str, missing: str = "") -> str:
 def machine() -> str:
     """Return the number of cores and the name of the processor."""
     cpu = next((text for text in Path("/proc/cpuinfo").read_text().splitlines() if text.startswith("model name")), "")
-    return f"{os.cpu_count()} cores, {cpu.partition(':')[2].strip() or 'unknown processor'}"
+    name = re.sub(r"\((R|TM)\)| Processor| CPU", "", cpu.partition(":")[2]).strip()
+    return f"{os.cpu_count()} cores, {name or 'unknown processor'}"
