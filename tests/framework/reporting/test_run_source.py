@@ -74,7 +74,10 @@ def test_run_contents_frames_without_pose_are_lost(directory: Path) -> None:
             "the first frame differs from the first frame of the run",
         ),
         ({"_target_": "os.system"}, "expected the _target_ of a registered option of"),
-        ({"_target_": "tests.support.scenes.corner_room.CornerRoom", "scene": "${oc.env:HOME}"}, "not resolved"),
+        (
+            {"_target_": "tests.support.scenes.corner_room.CornerRoom", "scene": "${oc.env:HOME}"},
+            "expected a resolved value",
+        ),
     ],
 )
 def test_run_source_other_dataset_is_rejected_with_reason(directory: Path, dataset: dict, message: str) -> None:

@@ -323,7 +323,7 @@ def test_voxel_hashing_icp_is_lost_after_bad_final_step(monkeypatch: pytest.Monk
     monkeypatch.setattr(voxel_hashing_icp, "_solved", lambda *_: np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
     poses, _ = run(VoxelHashingIcp(**ONE_STEP), frames)
     assert poses[1].lost
-    assert "agree with the map" in poses[1].reason
+    assert "match the map" in poses[1].reason
 
 
 def aligned(T_world_camera: np.ndarray, agreement: float = 0.85, behind: float = 0.05) -> Alignment:

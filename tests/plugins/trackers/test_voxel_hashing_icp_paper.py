@@ -140,7 +140,7 @@ def test_paper_tracker_frame_with_few_matching_points_is_lost() -> None:
     noise = np.random.default_rng(0).uniform(0.5, 4, frames[-1].depth.shape).astype(np.float32)
     poses = track_and_fuse(paper_tracker(), [*frames[:4], dataclasses.replace(frames[-1], depth=noise)])
     assert poses[-1].lost
-    assert "agree with the map" in poses[-1].reason
+    assert "match the map" in poses[-1].reason
     poses = track_and_fuse(paper_tracker("tracker.min_matched=1"), frames)
     assert all(pose.lost for pose in poses[1:])
 
