@@ -24,7 +24,7 @@ class GmmEm(ClusterRefiner):
     the mask. Background components are initialized by groups of points in a ring around the mask. A uniform component
     can represent outliers.
 
-    The mask is also evidence for the object (our choice), so that object and background cannot swap. The log-odds
+    The mask is also evidence for the object (our choice). Otherwise, object and background can swap. The log-odds
     decrease linearly from `mask_log_odds` inside the mask to -`mask_log_odds` in the ring. Pixels of known structure,
     found by an earlier refiner, are not part of the ring. Clusters with too few points in the mask or the ring are not
     changed. Without background components, only outliers are removed.

@@ -111,9 +111,9 @@ class VoxelHashingIcp(PoseTracker):
     # cut-off of point-to-plane distances, in standard deviations, in [0.001, 1000] (TUKEY)
     geometric_scale: float = 4.0
     photometric_scale: float = 4.0  # cut-off of intensity differences, in standard deviations, in [0.001, 1000] (TUKEY)
-    # standard deviation of intensity differences, for intensities in [0, 1], in [0.001, 1] (TUKEY)
+    # standard deviation of differences between intensities of 0 to 1, in [0.001, 1] (TUKEY)
     intensity_noise: float = 0.05
-    # intensity difference at which the weight reaches 0, for intensities in [0, 1], in [0.001, 1] (LINEAR)
+    # difference between intensities of 0 to 1 at which the weight reaches 0, in [0.001, 1] (LINEAR)
     max_intensity_difference: float = 0.1
     color_weight: float = 0.1  # weight lambda of the photometric term, >= 0; 0 = ICP only
     color_levels: int = 3  # number of levels with color, from the coarsest, in [1, 3]

@@ -51,7 +51,7 @@ def main() -> None:
     )
     add("--poses", metavar="TOPIC", default="", help=poses)
     odometry = (
-        f"odometry, a topic of a type of --poses; written to {ODOMETRY} for dataset.odometry, as camera poses if "
+        f"odometry, of a type listed for --poses; written to {ODOMETRY} for dataset.odometry, as camera poses if "
         "/tf_static contains the transform; default: none"
     )
     add("--odometry", metavar="TOPIC", default="", help=odometry)

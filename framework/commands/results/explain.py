@@ -88,8 +88,7 @@ def explain_run(record: Record, metric: str = "instances.ap50", with_contributio
     if record.is_imported or record.derived:
         found = record.derived or "an imported map"
         raise DataError(f"{record.directory}: expected a mapped sequence, got {found}; explain the original run")
-    check_resolved(record.config)
-    check_resolved({"dataset": record.dataset})  # with the ground truth named in metrics.json
+    check_resolved({**record.config, "dataset": record.dataset})  # with the ground truth named in metrics.json
     video = build(RGBDVideo, OmegaConf.create(dict(record.dataset)))
     if not isinstance(video, RGBDSequence):
         raise ConfigError(f"{record.directory}: expected a run of a sequence, got live video")

@@ -186,7 +186,7 @@ def check_depth_scale(where: str, depth_scale: float) -> None:
     if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
         raise DataError(
             f"{where}: expected {COARSEST_DEPTH:g} to {FINEST_DEPTH:g} units per m (1000 for millimeters), "
-            f"got {depth_scale:g}; correct the file, or set dataset.depth_scale"
+            f"got {depth_scale:g}; correct the file"
         )
 
 

@@ -25,7 +25,7 @@ from typing import BinaryIO
 import numpy as np
 
 from framework.data import MAX_PIXELS, Camera, Float64, UInt8, UInt16
-from framework.datasets.frames.conventions import COARSEST_DEPTH, FINEST_DEPTH
+from framework.datasets.frames.conventions import check_depth_scale
 from framework.datasets.frames.sequence_reader import StoredImages
 from framework.errors import DataError, FrameError, StorageError
 from framework.files.atomic_write import check_regular
@@ -179,9 +179,7 @@ def _read_header(path: Path, file: BinaryIO, length: int) -> SensHeader:
         if not 0 < width * height <= MAX_PIXELS:
             expected = f"expected {name} images of 1 to {MAX_PIXELS} px"
             raise DataError(f"{path}, byte {at + 8}: {expected}, got {width}x{height} px")
-    if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
-        expected = f"expected depth units per meter in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}]"
-        raise DataError(f"{path}, byte {at + 24}: {expected}, got {depth_scale:g}")
+    check_depth_scale(f"{path}, byte {at + 24}: depth scale", depth_scale)
     if frames > MAX_FRAMES or frames * FRAME.size > length:
         most = min(MAX_FRAMES, length // FRAME.size)
         raise DataError(f"{path}, byte {at + 28}: expected at most {most} frames in {length} bytes, got {frames}")

@@ -17,11 +17,9 @@ from framework.files.search_paths import candidates
 LIBRARIES = ("numpy", "opencv-python-headless", "torch", "onnxruntime", "transformers")
 """Libraries whose versions may change the last digits of the results."""
 
-SHARED_SOURCES = (
-    "detection/**/*.py",
-    "sensors/noise_models*.py",
-    "vocabulary/label_spaces.*",
-)  # code shared by detectors, in framework/
+SHARED_SOURCES = ("detection/**/*.py", "sensors/noise_models*.py", "vocabulary/label_spaces.*")
+"""Code shared by detectors, in framework/."""
+
 NOT_GIVEN = Path()  # value of an empty path in a config
 
 

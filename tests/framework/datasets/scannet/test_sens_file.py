@@ -98,8 +98,8 @@ def test_sens_file_truncated_header_raises(path: Path, length: int) -> None:
         (SIZES + 4, struct.pack("<i", OCCIPITAL), f"byte {SIZES + 4}: expected raw or zlib depth, got Occipital's"),
         (SIZES + 8, struct.pack("<I", 2**32 - 1), f"byte {SIZES + 8}: expected color images .*, got 4294967295x49 px"),
         (SIZES + 20, struct.pack("<I", 0), f"byte {SIZES + 8}: expected depth images .*, got 32x0 px"),
-        (SIZES + 24, struct.pack("<f", 0), f"byte {SIZES + 24}: .*depth units per meter"),
-        (SIZES + 24, struct.pack("<f", np.nan), f"byte {SIZES + 24}: .*depth units per meter"),
+        (SIZES + 24, struct.pack("<f", 0), f"byte {SIZES + 24}: depth scale: expected 1 to 1e"),
+        (SIZES + 24, struct.pack("<f", np.nan), f"byte {SIZES + 24}: depth scale: expected 1 to 1e"),
         (
             SIZES + 28,
             struct.pack("<Q", 2**64 - 1),
