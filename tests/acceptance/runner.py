@@ -24,7 +24,7 @@ make acceptance
 
 The command runs missing and outdated measurements. A measurement is outdated if its code has changed. All measurements
 take about five hours. `make acceptance MEASUREMENT=NAME` runs one of them. Real sequences are read from
-`../shared/data`.
+`redkitchen`, `replica_floor2`, `scannet_scene0000` and `tum_fr1_rpy_a` in `../shared/data`.
 
 - `building_*`: worst of three buildings with five rooms each, unless stated otherwise
 - *oracle*: map from the corrected poses and depth

@@ -31,24 +31,24 @@ python -m tests.endurance --frames 1000 --out outputs/endurance
 ```
 
 The first command maps {frames:,} frames of {places} sequences in one process. The second is a short test that
-may exceed the bounds. Real sequences are read from `../shared/data`. The process cycles through the sequences and maps
-each one several times:
+may exceed the bounds. The first command overwrites this page. Real sequences are read from `redkitchen` and
+`tum_fr1_rpy_a` in `../shared/data`. The process cycles through the sequences and maps each one several times:
 
 - redkitchen, freiburg1_rpy: Kinect recordings, forward and backward
 - standing: one frame of redkitchen, repeated with new noise
-- room: rendered room, with different objects on the backward pass
+- room: rendered room, with different objects on the way back
 
 ![Processor time, heap, process memory, instances and position error over all frames](endurance.png)
 """
 BOUNDS_INTRODUCTION = """Except for drift and lost frames, growth is the median slope over all pairs of passes
 through a sequence, with quartiles in brackets. The first passes through each sequence are excluded, because tentative
 instances have not expired yet. Values are bold if their lower quartile exceeds the bound, and italic if only their
-median does (possibly noise).
+median does.
 """
 METHOD = """
 Processor time is relative to a reference computation. For a more precise measurement, see `long_run_slowdown` in
 [Acceptance](acceptance.md). Heap is the memory allocated while a sequence is mapped. Drift is the largest later
-position error (RMS of a pass) minus the first. Sensor noise adds map blocks at depth edges. Repeated images repeat
+position error (RMS of a pass) minus that of the first compared pass. Sensor noise adds map blocks at depth edges. Repeated images repeat
 detection errors, which add instances.
 """
 
