@@ -92,11 +92,19 @@ def environment() -> dict[str, str | int]:
 
 @cache
 def frozen_environment() -> str:
-    """Return the versions of Python and all installed packages in the format of pip constraints."""
+    """Return the versions of Python and all installed packages in the format of pip constraints.
+
+    PyPI has no local versions such as 2.13.0+cpu, so they are written as 2.13.0.
+    """
     # interrupted installations leave packages without a name
     named = [package for package in distributions() if "Name" in package.metadata]
-    packages = {f"{package.name}=={package.version}" for package in named if package.name != "instancemap"}
+    packages = {f"{one.name}=={public_version(one.version)}" for one in named if one.name != "instancemap"}
     return "\n".join([f"# Python {platform.python_version()}", *sorted(packages, key=str.lower)]) + "\n"
+
+
+def public_version(version: str) -> str:
+    """Return a version without its local part: 2.13.0 for 2.13.0+cpu."""
+    return version.partition("+")[0]
 
 
 def _git(directory: Path, *arguments: str) -> str | None:

@@ -14,7 +14,7 @@ from framework.files.atomic_write import read_text
 from framework.files.manifest import Manifest, verified
 from framework.runs.inputs import ROOT, input_hashes
 from framework.runs.plugin_code import changed_code, plugin_code
-from framework.runs.provenance import code_version, leaves, package_version, parameters_of
+from framework.runs.provenance import code_version, leaves, package_version, parameters_of, public_version
 from framework.runs.stored_runs import (
     CONFIG,
     DEPTH_DISTORTION,
@@ -97,7 +97,7 @@ def _changed_packages(path: Path) -> Iterator[str]:
     before = dict(line.split("==", 1) for line in read_text(path).splitlines() if "==" in line)
     for package in PACKAGES:
         now = package_version(package)
-        if package in before and before[package] != now:
+        if package in before and public_version(before[package]) != public_version(now or ""):
             yield (
                 f"{package}: expected version {before[package]}, got {now or 'none'}; install with the constraints in "
                 f"{path}"

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from omegaconf import OmegaConf
 
 from framework.checking.changed_sequences import ChangedSequence
@@ -27,10 +28,11 @@ from framework.files.manifest import Manifest, RunStatus
 from framework.files.tum_trajectory import read_tum
 from framework.pipeline import Pipeline
 from framework.pose_graph.graph_file import read_pose_graph
-from framework.runs import provenance, run_directory
+from framework.runs import provenance, reproduction, run_directory
 from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
 from framework.runs.metrics import doubled_metrics, instance_metrics, run_metrics, trajectory_metrics
+from framework.runs.reproduction import causes
 from framework.runs.run_directory import RunRecord, headline
 from framework.runs.stored_runs import MAPPED, read_record
 from framework.runtime.corrected_frames import TrackedFrame
@@ -115,6 +117,19 @@ def test_environment_lists_installed_packages(record: RunRecord, room: CornerRoo
     lines = (record.directory / "environment.txt").read_text().splitlines()
     assert lines[0] == f"# Python {platform.python_version()}"
     assert f"numpy=={np.__version__}" in lines
+    assert f"torch=={torch.__version__.partition('+')[0]}" in lines
+
+
+def test_causes_contain_changed_packages_of_environment(
+    record: RunRecord, room: CornerRoom, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record.write(room, mapped(room))
+    run = read_record(record.directory)
+    versions = {"numpy": "0.1", "torch": f"{torch.__version__.partition('+')[0]}+cu130"}
+    monkeypatch.setattr(reproduction, "PACKAGES", tuple(versions))
+    monkeypatch.setattr(reproduction, "package_version", versions.get)
+    [cause] = causes(run)
+    assert cause.startswith(f"numpy: expected version {np.__version__}, got 0.1; install with the constraints in ")
 
 
 def test_metrics_contain_all_documented_keys(record: RunRecord, room: CornerRoom) -> None:
