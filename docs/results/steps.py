@@ -32,7 +32,7 @@ SEED = 0  # random seed, reset for each row
 SYNTHETIC = "synthetic"  # dataset with one scene per seed
 START, END = "paper", "default"
 BENEFIT = 0.005  # AP, minimum relevant mean difference
-LINE_MM, HEAD_MM, AXIS_MM, NAMES_MM, GAP_MM = 3.4, 6.0, 5.0, 34.0, 3.0
+LINE_MM, HEAD_MM, AXIS_MM, NAMES_MM, GAP_MM = 3.4, 6.0, 5.0, 38.0, 3.0
 REAL_COLOR, SYNTHETIC_COLOR = "#0072b2", "#d55e00"  # for color-blind readers
 
 
@@ -195,13 +195,14 @@ def page(scenes: Sequence[Scene], bases: dict[str, str | None], metric: str) -> 
     height = HEAD_MM + LINE_MM * len(bases) + AXIS_MM
     counts = [sum(one.synthetic == synthetic for one in scenes) for synthetic in (False, True)]
     compared = "the row above (below the line: default)" if END in bases.values() else next(iter(bases))
+    groups = (("Blue: real scenes", counts[0]), ("Orange: synthetic scenes", counts[1]))
+    colors = ". ".join(f"{name}, n = {count} pairs of scene and detector" for name, count in groups if count)
     note = (
-        f"{head(metric)}. Blue: real scenes, n = {counts[0]} pairs of scene and detector; orange: synthetic, n = "
-        f"{counts[1]}. Left: mean. Right: mean paired difference from {compared}, with its {CONFIDENCE:.0%} interval. "
-        f"Gray band: differences below {BENEFIT}."
+        f"{head(metric)}. {colors}. Left: mean. Right: mean paired difference from {compared}, with its "
+        f"{CONFIDENCE:.0%} interval. Gray band: differences below {BENEFIT}."
     )
     result = Page(PAGE_MM, height, note)
-    width = (PAGE_MM - NAMES_MM - 2 * GAP_MM - MARGIN_MM) / 2
+    width = (PAGE_MM - NAMES_MM - 3 * GAP_MM - MARGIN_MM) / 2
     lefts = (NAMES_MM, NAMES_MM + width + 2 * GAP_MM)
     means, differences = (result.axes(left, AXIS_MM, width, height - HEAD_MM - AXIS_MM) for left in lefts)
     rows = list(bases)
