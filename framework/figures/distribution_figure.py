@@ -42,7 +42,7 @@ def bar_figure(pictured: Pictured) -> Page:
     """
     note = (
         f"Bars: mean over the runs of each {pictured.unit}. Points: runs. Black lines: {CONFIDENCE:.0%} bootstrap "
-        f"interval (BCa) of the mean over the runs, from {MIN_UNITS} runs on."
+        f"interval (BCa) of the mean over at least {MIN_UNITS} runs."
     )
     return _figure(pictured, _draw_bar, note)
 

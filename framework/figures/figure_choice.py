@@ -47,7 +47,7 @@ class FigureChoice:
     names: dict[str, str] = field(default_factory=dict)  # display names of rows, or of values of `by` and `color_by`
     zoom: bool = False  # True = add a close-up of the largest difference between the columns; only for `maps`
     metric: str | None = None  # key of metrics.json; None = instances.ap50, or instances.count for `progress`
-    by: str | None = None  # KEY with one bar, box, point, line or line of cells per value; None = one per row
+    by: str | None = None  # KEY with one bar, box, point, curve or row of cells per value; None = one per row
     color_by: str | None = None  # KEY with one color per value, for `bar`, `box` and `tradeoff`; None = one color
     x: str | None = None  # horizontal axis: numeric KEY for `curve`, metric for `tradeoff`; None = fps for `tradeoff`
     page_columns: int | None = None  # width in columns of the page, 1 or 2; None = 2 for `class_heatmap`, otherwise 1

@@ -1,4 +1,4 @@
-"""Layouts of a comparison: one line per row, one column per sequence, or one group of lines per sequence.
+"""Layouts of a comparison: one column per metric, one column per sequence, or one group of rows per sequence.
 
 In the layouts with sequences, rows with the same pose source are adjacent, and the best mean among them is bold unless
 several rows have it. Means over fewer runs than the others are not compared.
@@ -137,7 +137,7 @@ def across_grid(comparison: ComparisonTable) -> TextTable:
 
 
 def by_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a table with one group of lines per sequence, and one line per row. The last group contains the means."""
+    """Return a table with one group of rows per sequence. The last group contains the means."""
     keys = comparison.choice.columns
     rows = [row for rows in _by_peers(comparison.rows) for row in rows]
     figures = [_SequenceFigures(comparison, key) for key in keys]

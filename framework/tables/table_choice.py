@@ -27,16 +27,16 @@ PLAIN = (
 class TableChoice:
     """The block `table` of an experiment.
 
-    Each line is a row and each column a metric. Cells are means over the runs that differ only in `average_over`. With
-    `columns_by`, each column is a value of that key, such as a sequence, and the last column is the mean. With
-    `group_by`, each value of that key has a group of lines. A KEY is a parameter such as dataset.scene, or a group of
+    Each row is a method and each column a metric. Cells are means over the runs that differ only in `average_over`.
+    With `columns_by`, each column is a value of that key, such as a sequence, and the last column is the mean. With
+    `group_by`, each value of that key has a group of rows. A KEY is a parameter such as dataset.scene, or a group of
     options such as dataset.
     """
 
     average_over: list[str] = field(default_factory=lambda: ["seed"])  # KEYs to average over
     columns_by: str | None = None  # KEY with one column per value; None = one column per metric
-    group_by: str | None = None  # KEY with one group of lines per value; None = one line per row
-    # KEYs of the pairs for comparisons, out of the keys above; [] = pairs of runs, averaged by the last key above
+    group_by: str | None = None  # KEY with one group of rows per value; None = no groups
+    # KEYs that define the pairs, out of `average_over`, `columns_by` and `group_by`; [] = pairs of runs
     pair_by: list[str] = field(default_factory=list)
     # values, or lists of values, by KEY; other runs are omitted; {} = all runs
     where: dict[str, Any] = field(default_factory=dict)

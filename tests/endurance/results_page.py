@@ -48,8 +48,8 @@ median does.
 METHOD = """
 Processor time is relative to a reference computation. For a more precise measurement, see `long_run_slowdown` in
 [Acceptance](acceptance.md). Heap is the memory allocated while a sequence is mapped. Drift is the largest later
-position error (RMS of a pass) minus that of the first compared pass. Sensor noise adds map blocks at depth edges. Repeated images repeat
-detection errors, which add instances.
+position error (RMS of a pass) minus that of the first compared pass. Sensor noise adds map blocks at depth edges.
+Repeated images repeat detection errors, which add instances.
 """
 
 
