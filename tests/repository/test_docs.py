@@ -195,7 +195,7 @@ def test_argument_table_has_options_of_help(built: Path, command: str, name: str
 def test_table_settings_are_documented(built: Path) -> None:
     page = re.sub(r"<[^>]+>", "", (built / "guides" / "comparing_runs.html").read_text())
     assert not [setting.name for setting in fields(TableChoice) if f"table.{setting.name}" not in page]
-    assert "KEYs of the pairs for comparisons" in page  # comment on the line above the field
+    assert "KEYs that define the pairs" in page  # comment on the line above the field
 
 
 def test_project_files_are_pages_with_valid_links(built: Path) -> None:
